@@ -30,6 +30,8 @@ from small_runs import edited, small_run  # noqa: E402
 START_SECONDS = 120
 LONGEST_SECONDS = 15.0
 """A request without an answer for so long shows that the service hangs."""
+HOST = "fluoromap.example"
+"""The name under which a proxy reaches the service."""
 TOKENS = {"admin": "admin", "writer": "write", "reader": "read"}
 TRAPPED = (
     "numpy",
@@ -145,6 +147,12 @@ class AttackedService:
         httpx.get(f"{self.url}/v1/health", trust_env=False, timeout=LONGEST_SECONDS)
         return time.monotonic() - start
 
+    def restart(self) -> None:
+        """Stop the API as an operator does, and start it again."""
+        self.api.terminate()
+        self.api.wait(START_SECONDS)
+        self.url, self.api = _start_api(self.stack, self.environment)
+
     def revive(self) -> bool:
         """Start a dead or hanging API again; return whether it was."""
         with contextlib.suppress(httpx.HTTPError):
@@ -170,7 +178,9 @@ def attacked_service() -> Iterator[AttackedService]:
         environment = {key: value for key, value in os.environ.items() if not key.startswith("FLUOROMAP_")}
         environment.pop("PYTHONSAFEPATH", None)
         environment.setdefault("NUMBA_CACHE_DIR", str(folder / "numba"))
-        environment |= {"FLUOROMAP_DATA_DIR": str(folder / "data"), "FLUOROMAP_WORKERS": "1"}
+        environment |= {
+            "FLUOROMAP_DATA_DIR": str(folder / "data"), "FLUOROMAP_WORKERS": "1", "FLUOROMAP_ALLOWED_HOSTS": HOST,
+        }  # fmt: skip
         tokens = {
             name: subprocess.run(
                 [program(), "token", "create", "--name", name, "--scope", scope],

@@ -25,7 +25,7 @@ from urllib.parse import urlsplit
 import httpx
 import psutil
 import pydicom
-from attacked_service import LONGEST_SECONDS, AttackedService, Broken
+from attacked_service import HOST, LONGEST_SECONDS, START_SECONDS, AttackedService, Broken
 
 BUSY_SECONDS = 2.0
 """Longest answer to a hostile request."""
@@ -138,6 +138,8 @@ def hostile_values(service: AttackedService) -> str:
     worst: list[str] = []
     requests, slowest = 0, 0.0
     with service.client("reader") as client, _watched_health(service) as health:
+        # The first search of a process compiles its kernels, whatever the values are.
+        client.get(f"{study}/instances/{uid}/frames/1/preview", timeout=START_SECONDS).raise_for_status()
         for number, (path, names) in enumerate(_reading_routes(client)):
             filled = re.sub(r"\{(\w+)\}", lambda part: known.get(part[1], "0" * 32), path)
             calls: list[tuple[str, dict[str, str]]] = []
@@ -195,6 +197,36 @@ def _median_seconds(request: Callable[[], httpx.Response]) -> float:
         request().raise_for_status()
         seconds.append(time.monotonic() - start)
     return sorted(seconds)[4]
+
+
+@_attack("60 readers' requests at once for the electrodes of a frame, beside a list of studies and an upload")
+def many_previews(service: AttackedService) -> str:
+    study = service.study()
+    uid, _ = service.run(study)
+    route = f"{study}/instances/{uid}/frames/1/preview"
+    with service.client("reader") as client:
+        client.get(route, timeout=START_SECONDS).raise_for_status()
+    stop = threading.Event()
+
+    def ask() -> None:
+        with service.client("reader") as client:
+            while not stop.is_set():
+                with suppress(httpx.HTTPError):
+                    client.get(route, timeout=3)
+
+    with ThreadPoolExecutor(60) as pool:
+        for _ in range(60):
+            pool.submit(ask)
+        try:
+            with service.client("writer") as client:
+                beside = _median_seconds(lambda: client.get("/v1/studies"))
+            start = time.monotonic()
+            service.run(study)
+            upload = time.monotonic() - start
+        finally:
+            stop.set()
+    seen = f"a list took {beside:.2f} s, an upload {upload:.2f} s"
+    return _hold(beside < BUSY_SECONDS and upload < 2 * BUSY_SECONDS, seen)
 
 
 @_attack("eight archive-wide searches at once over 300 runs, beside an upload", short=False)
@@ -380,7 +412,7 @@ def stolen_cookie(service: AttackedService) -> str:
         cookie = answer.headers["set-cookie"]
         value = cookie.split("=", 1)[1].split(";", 1)[0].strip('"')
         # A cookie of the example's name shows what a proxy's user gets.
-        far = client.post("/session", headers={"Authorization": f"Bearer {token}", "Host": "fluoromap.example"})
+        far = client.post("/session", headers={"Authorization": f"Bearer {token}", "Host": HOST})
         header = {"Cookie": f"{cookie.split('=', 1)[0]}={value}"}
         client.cookies.clear()
         before = client.get("/v1/studies", headers=header).status_code
@@ -531,14 +563,14 @@ def unseen_requests(service: AttackedService) -> str:
         client.get(second)
         client.patch(first, json={"label": "changed"})
         client.get(_place(content), headers={"Accept": "*/*"})
+    # Refusals wait for their minute, or for the end of the service.
+    service.restart()
     entries = _trail(service)[before:]
     ids = [study.rsplit("/", 1)[1] for study in (first, second)]
     reads = {str(entry.get("study")) for entry in entries if entry.get("status") == 200}
     refusals = [entry for entry in entries if entry.get("status") == 403]
     downloads = [
-        entry
-        for entry in entries
-        if "/dicom-web/studies/{" in str(entry.get("action", entry)) and entry.get("status") == 200
+        entry for entry in entries if "/dicom-web/studies/{" in str(entry["what"]) and entry.get("status") == 200
     ]
     with_study = [entry for entry in downloads if entry.get("study") or entry.get("studies")]
     seen = (
@@ -656,8 +688,8 @@ def endless_answers(service: AttackedService) -> str:
             most = max(most, _memory_mib(sender))
             with service.client() as client:
                 for delivery in client.get("/v1/deliveries").json()["items"]:
-                    if delivery.get("attempts") and delivery.get("state") != "sending":
-                        attempt.setdefault(delivery["target"], delivery["state"])
+                    if delivery["error"]:
+                        attempt.setdefault(delivery["target"], delivery["error"]["code"])
             time.sleep(0.1)
         most = max(most, _memory_mib(sender))
     seen = (

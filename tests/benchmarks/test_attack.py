@@ -12,8 +12,9 @@ import pytest
 
 CAMPAIGN = Path(__file__).parent.parent.parent / "benchmarks" / "attack.py"
 SHORT = {
-    "wildcard-patterns", "hostile-values", "many-waiting-readers", "unfinished-headers", "readers-that-take-nothing",
-    "readiness-writes", "token-walk", "paths-outside", "guessed-tokens", "open-behind-a-proxy", "stolen-cookie", "narrow-tokens",
+    "wildcard-patterns", "hostile-values", "many-waiting-readers", "many-previews", "unfinished-headers",
+    "readers-that-take-nothing", "readiness-writes", "token-walk", "paths-outside", "guessed-tokens", "open-behind-a-proxy",
+    "stolen-cookie", "narrow-tokens",
     "foreign-host", "damaged-runs", "lost-updates", "remains-of-a-study", "unseen-requests", "shortened-trail", "endless-answers",
     "code-of-the-current-folder",
 }  # fmt: skip

@@ -335,6 +335,9 @@ def test_what_is_not_there_or_not_offered(service: TestClient, two_runs: list[by
     assert service.get(f"{STUDIES}/1.2.3").status_code == 404
     assert service.get(f"{run}/frames/4").status_code == 404
     assert service.get(f"{run}/frames/x").status_code == 400
+    # A reader must not keep the service at work by a list without end.
+    assert service.get(f"{run}/frames/1,2,3").status_code == 200
+    assert service.get(f"{run}/frames/1,2,3,1").status_code == 400
     for accept in ("image/jpeg", 'multipart/related; type="application/dicom"; transfer-syntax=1.2.840.10008.1.2.4.50'):
         assert service.get(run, headers={"accept": accept}).status_code == 406
     assert service.get(f"{run}/frames/1", headers={"accept": "multipart/related; type=image/jpeg"}).status_code == 406

@@ -21,6 +21,7 @@ from fluoromap_service.api.dicomweb.display import (
     WindowFunction,
 )
 from fluoromap_service.api.dicomweb.stored import existing
+from fluoromap_service.api.http.middleware.download_limit import PICTURE
 from fluoromap_service.api.http.routers import new_router
 from fluoromap_service.api.http.security import Reader
 from fluoromap_service.problem import Problem, not_found
@@ -35,13 +36,13 @@ _FUNCTIONS: dict[str, WindowFunction] = {
 }  # fmt: skip
 
 
-@router.get("/studies/{study_uid}/series/{series_uid}/instances/{uid}/rendered")
+@router.get("/studies/{study_uid}/series/{series_uid}/instances/{uid}/rendered", dependencies=[PICTURE])
 def render_instance(study_uid: str, series_uid: str, uid: str, request: Request, caller: Reader) -> Response:
     """Return the first frame of an instance as a picture."""
     return _rendered(request, study_uid, series_uid, uid, "1")
 
 
-@router.get("/studies/{study_uid}/series/{series_uid}/instances/{uid}/frames/{number}/rendered")
+@router.get("/studies/{study_uid}/series/{series_uid}/instances/{uid}/frames/{number}/rendered", dependencies=[PICTURE])
 def render_frame(study_uid: str, series_uid: str, uid: str, number: str, request: Request, caller: Reader) -> Response:
     """Return a frame as a picture; ``number`` counts from 1."""
     return _rendered(request, study_uid, series_uid, uid, number)

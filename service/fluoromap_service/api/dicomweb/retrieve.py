@@ -118,6 +118,8 @@ def retrieve_frames(
     if not re.fullmatch(r"[0-9]{1,5}(,[0-9]{1,5})*", numbers):
         raise Problem(400, "malformed", "The frames are no list of numbers; write them as in frames/1,2,3.")
     wanted = [int(number) for number in numbers.split(",")]
+    if len(wanted) > max(instance.frames, 1):
+        raise Problem(400, "malformed", "The list has more frames than the instance; name each frame once.")
     form = answer_form(request, _PIXELS, [_EXPLICIT_LITTLE_ENDIAN] * len(wanted))
     if not all(1 <= number <= instance.frames for number in wanted):
         raise not_found("frame")

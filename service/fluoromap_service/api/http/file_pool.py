@@ -92,6 +92,10 @@ for _process in _processes:
     _idle.put(_process)
 
 
+_free_for_searches = threading.BoundedSemaphore(PROCESSES - 1)
+"""Searches take long: a process remains for uploads and pictures."""
+
+
 def run_in_pool(
     task: Task, function: Callable[Arguments, Answer], *arguments: Arguments.args, **keywords: Arguments.kwargs
 ) -> Answer:  # fmt: skip
@@ -103,6 +107,19 @@ def run_in_pool(
         422 ``undecodable`` when the function breaks its process or exceeds the memory limit. 503 ``too_slow`` when it exceeds the
         time limit. 429 ``busy`` when too many requests wait for the pool. A ``Problem`` that the function raises passes unchanged.
     """
+    if task is not Task.FIND_ELECTRODES:
+        return _run_when_free(task, function, *arguments, **keywords)
+    if not _free_for_searches.acquire(timeout=LONGEST_WAIT_SECONDS):
+        raise _busy()
+    try:
+        return _run_when_free(task, function, *arguments, **keywords)
+    finally:
+        _free_for_searches.release()
+
+
+def _run_when_free(
+    task: Task, function: Callable[Arguments, Answer], *arguments: Arguments.args, **keywords: Arguments.kwargs
+) -> Answer:  # fmt: skip
     # The time limit begins when a process is free, so that a request that waited long keeps its full time.
     try:
         process = _idle.get(timeout=LONGEST_WAIT_SECONDS)

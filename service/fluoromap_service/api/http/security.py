@@ -58,6 +58,7 @@ class Doorkeeper:
             # Before the check of its scopes, so that the audit trail names the caller of a refused request.
             scope.setdefault("state", {})["caller"] = caller
             _demand(caller, _needed(scope))
+            scope["state"]["is_let_in"] = functools.partial(self._is_let_in, connection)
         except Problem as problem:
             if problem.status == 401 and _opens_page(connection):
                 await RedirectResponse(SIGN_IN, 303)(scope, receive, send)
@@ -71,9 +72,7 @@ class Doorkeeper:
 
     async def _identify(self, connection: HTTPConnection) -> Caller:
         credential = _credential(connection)
-        caller = self._callers.remembered(credential)
-        if caller is None:
-            caller = await to_thread.run_sync(self._callers.look_up, credential, limiter=_threads())
+        caller = await self._caller_of(credential)
         if caller is None:
             raise await self._refusal(connection, credential)
         if caller is auth.OPEN:
@@ -81,6 +80,20 @@ class Doorkeeper:
         else:
             check_host(connection)
         return caller
+
+    async def _caller_of(self, credential: Credential | None) -> Caller | None:
+        caller = self._callers.remembered(credential)
+        if caller is None:
+            caller = await to_thread.run_sync(self._callers.look_up, credential, limiter=_threads())
+        return caller
+
+    async def _is_let_in(self, connection: HTTPConnection) -> bool:
+        """Return whether the token or session of a request that lasts is still valid."""
+        try:
+            return await self._caller_of(_credential(connection)) is not None
+        except DATABASE_AWAY:
+            # It holds nothing new for the request either.
+            return True
 
     async def _refusal(self, connection: HTTPConnection, credential: Credential | None) -> Problem:
         if credential is None:

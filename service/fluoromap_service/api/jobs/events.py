@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Annotated
 
 from fastapi import Depends, Header, Request
@@ -23,6 +24,8 @@ router = new_router(tags=["jobs"])
 
 COMMENT_SECONDS = 15.0
 """Silence after which a comment keeps the connection open."""
+CHECK_SECONDS = 5.0
+"""Time over which a stream takes its token as valid, so that it does not ask the database for each event."""
 
 
 class _EventStream(StreamingResponse):
@@ -76,25 +79,35 @@ async def follow_job(
     """Send the events `job` (state, error) and `stage` (name, subject, state, attempt, progress, reused).
 
     The stream begins with the first event of the job, or after `Last-Event-ID`. Comments keep the connection open. The stream
-    ends after the job. It ends earlier when the service ends; then connect again with `Last-Event-ID`.
+    ends after the job. It ends earlier when the service ends; then connect again with `Last-Event-ID`. It also ends with the token.
     """
     watch: JobWatch = request.app.state.job_watch
     # For a proxy that would hold back the events.
-    return _EventStream(_pieces(watch, job_id, after), headers={"Cache-Control": "no-cache", "X-Accel-Buffering": "no"})
+    pieces = _pieces(watch, job_id, after, request.state.is_let_in)
+    return _EventStream(pieces, headers={"Cache-Control": "no-cache", "X-Accel-Buffering": "no"})
 
 
-async def _pieces(watch: JobWatch, job_id: str, after: int) -> AsyncIterator[bytes]:
+async def _pieces(
+    watch: JobWatch, job_id: str, after: int, is_let_in: Callable[[], Awaitable[bool]]
+) -> AsyncIterator[bytes]:
     sent: set[int] = set()
+    checked = time.monotonic()
     with watch.following(job_id, after) as follower:
         while True:
             try:
                 async with asyncio.timeout(COMMENT_SECONDS):
-                    news = await follower.next()
+                    news, is_silent = await follower.next(), False
             except TimeoutError:
+                news, is_silent = None, True
+            if time.monotonic() - checked >= CHECK_SECONDS:
+                if not await is_let_in():
+                    return
+                checked = time.monotonic()
+            if news is None:
+                if not is_silent:
+                    return
                 yield KEEPALIVE_COMMENT
                 continue
-            if news is None:
-                return
             fresh = {event.id: event.text for event in news.events if event.id > after and event.id not in sent}
             sent.update(fresh)
             if fresh:

@@ -12,6 +12,7 @@ from pydantic import BaseModel, Field
 from fluoromap.catheters import Catalogue
 from fluoromap_service.api.http.etags import is_known, not_modified
 from fluoromap_service.api.http.file_pool import Task, run_in_pool
+from fluoromap_service.api.http.middleware.download_limit import PICTURE
 from fluoromap_service.api.http.paths import FrameNumber, InstanceUid, StudyId
 from fluoromap_service.api.http.problems import responses
 from fluoromap_service.api.http.routers import new_router
@@ -53,6 +54,7 @@ class PreviewOut(BaseModel):
 
 @router.get(
     "/{uid}/frames/{n}.png",
+    dependencies=[PICTURE],
     response_class=Response,
     responses={
         200: {
@@ -98,7 +100,11 @@ def get_frame(
     )
 
 
-@router.get("/{uid}/frames/{n}/preview", responses=responses(401, 403, 404, 409, 422, 429, 503))
+@router.get(
+    "/{uid}/frames/{n}/preview",
+    dependencies=[PICTURE],
+    responses=responses(401, 403, 404, 409, 422, 429, 503),
+)
 def get_preview(study_id: StudyId, uid: InstanceUid, n: FrameNumber, caller: Reader) -> PreviewOut:
     """Find the electrodes of one frame without a job, for showing only.
 

@@ -28,16 +28,25 @@ LARGE = {
 }
 
 
+PICTURES = {
+    "/dicom-web/studies/{study_uid}/series/{series_uid}/instances/{uid}/rendered",
+    "/dicom-web/studies/{study_uid}/series/{series_uid}/instances/{uid}/frames/{number}/rendered",
+    "/v1/studies/{study_id}/instances/{uid}/frames/{n}.png",
+    "/v1/studies/{study_id}/instances/{uid}/frames/{n}/preview",
+}
+
+
 class _Downloads:
     """An application whose answers end when the test says so."""
 
-    def __init__(self) -> None:
+    def __init__(self, what: str = "take_download") -> None:
+        self._what = what
         self.end = asyncio.Event()
         self.running: list[str] = []
         self.limit = DownloadLimit(self._answer)
 
     async def _answer(self, scope: Any, receive: Any, send: Any) -> None:
-        await scope["state"]["take_download"]()
+        await scope["state"][self._what]()
         self.running.append(scope["state"]["caller"].name)
         await self.end.wait()
 
@@ -83,16 +92,39 @@ def test_a_download_that_waits_too_long_is_refused(data_dir: object, monkeypatch
     asyncio.run(run())
 
 
-def test_the_routes_of_large_files_are_limited() -> None:
-    app: FastAPI = create_app()
-    limited = {
+def test_pictures_of_one_caller_wait_for_each_other(data_dir: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def run() -> None:
+        pictures, most = _Downloads("take_picture"), download_limit.PICTURES
+        tasks = [pictures.start("greedy") for _ in range(most + 60)] + [pictures.start("other")]
+        await _begun(tasks)
+        assert sorted(pictures.running) == ["greedy"] * most + ["other"]
+        monkeypatch.setattr(download_limit, "WAIT_SECONDS", 0.01)
+        with pytest.raises(Problem) as refused:
+            await pictures.start("greedy")
+        assert (refused.value.status, refused.value.code) == (429, "busy")
+        pictures.end.set()
+        await asyncio.gather(*tasks)
+
+    asyncio.run(run())
+
+
+def _limited_by(app: FastAPI, limit: Any) -> set[str]:
+    return {
         route.path
         for route in app.routes
-        if isinstance(route, APIRoute)
-        and any(below.call is download_limit._take for below in route.dependant.dependencies)
+        if isinstance(route, APIRoute) and any(below.call is limit.dependency for below in route.dependant.dependencies)
     }
+
+
+def test_the_routes_of_large_files_are_limited() -> None:
+    app: FastAPI = create_app()
+    limited = _limited_by(app, download_limit.LARGE_DOWNLOAD)
     assert limited == LARGE
     zipped = {
         route.path for route in app.routes if isinstance(route, APIRoute) and "application/zip" in str(route.responses)
     }
     assert zipped <= limited
+
+
+def test_the_routes_of_pictures_are_limited() -> None:
+    assert _limited_by(create_app(), download_limit.PICTURE) == PICTURES

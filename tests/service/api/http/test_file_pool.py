@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from pathlib import Path
 
 import psutil
@@ -28,6 +28,10 @@ def _die() -> None:
 
 def _refuse() -> None:
     raise dicom_problem(DicomCode.UNDECODABLE, "This frame is broken.", "PixelData")
+
+
+def _read(path: Path) -> str:
+    return path.read_text()
 
 
 def _hang() -> None:
@@ -119,3 +123,18 @@ def test_the_processes_end_with_a_killed_service(tmp_path: Path) -> None:
     service.wait()
     _, alive = psutil.wait_procs(processes, timeout=60)
     assert alive == []
+
+
+def test_searches_leave_a_process_to_other_requests(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with ThreadPoolExecutor(2) as threads:
+        # Each search lasts until somebody has written to the pipe.
+        searches = [threads.submit(run_in_pool, Task.FIND_ELECTRODES, _read, pipe) for _ in range(2)]
+        with pipe.open("w"):
+            picture = run_in_pool(Task.DRAW_PICTURE, _double, 2)
+            assert not any(search.done() for search in searches)
+        # Else the first search may take this for its own end.
+        wait(searches, return_when=FIRST_COMPLETED)
+        pipe.write_text("")
+        assert [picture, *(search.result() for search in searches)] == [4, "", ""]

@@ -16,8 +16,9 @@ from sql_statements import sql_statements
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
+from fluoromap_service import auth
 from fluoromap_service.api.http import stopping
-from fluoromap_service.api.jobs import job_watch
+from fluoromap_service.api.jobs import events, job_watch
 from fluoromap_service.api.jobs.job_watch import Follower, JobWatch
 
 
@@ -47,6 +48,26 @@ def test_everything_that_happened_and_the_end(client: TestClient, study: Finishe
     ended = [event["data"] for event in events if event["event"] == "stage" and event["data"]["state"] == "done"]
     assert len(ended) == 9
     assert set(ended[0]) == {"name", "subject", "state", "attempt", "progress", "reused"}
+
+
+def test_the_stream_ends_with_the_token(
+    client: TestClient, study: FinishedStudy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(events, "CHECK_SECONDS", 0.0)
+    auth.create_token("other", ["read", "write"])
+    token = auth.create_token("reader", ["read"])
+    revoked = threading.Event()
+
+    async def revoke_first(follower: Follower, following: Any = Follower.next) -> Any:
+        if not revoked.is_set():
+            await asyncio.to_thread(auth.revoke_token, "reader")
+            revoked.set()
+        return await following(follower)
+
+    monkeypatch.setattr(Follower, "next", revoke_first)
+    study.finish()
+    assert _stream(client, study, Authorization=f"Bearer {token}") == []
+    assert client.get("/v1/studies", headers={"Authorization": f"Bearer {token}"}).status_code == 401
 
 
 def test_resuming_gives_only_what_came_later(client: TestClient, study: FinishedStudy) -> None:
