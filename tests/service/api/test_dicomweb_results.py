@@ -179,7 +179,8 @@ def test_frames_that_are_asked_for_at_once_are_drawn_once(
         for each in service.get(f"{ADDRESS}/metadata").json()
         if each.get("00200011", {}).get("Value") == [9011]
     ]
-    with ThreadPoolExecutor(4) as threads:
+    # Entered, the client runs all requests in one event loop, as a server does.
+    with service, ThreadPoolExecutor(4) as threads:
         numbers = [1, 2, 1, 2]
         frames = list(
             threads.map(
