@@ -38,7 +38,7 @@ def test_check_of_a_sound_store(fluoromap: Program, first_token: str) -> None:
 def test_check_of_a_store_that_lacks_a_run(fluoromap: Program, first_token: str, tmp_path: Path) -> None:
     with closing(sqlite3.connect(tmp_path / "data" / "fluoromap.sqlite")) as database, database:
         database.execute("INSERT INTO file (sha256) VALUES (?)", ("f" * 64,))
-        database.execute("INSERT INTO instance VALUES ('1.2.3', ?, '1', '2', '{}')", ("f" * 64,))
+        database.execute("INSERT INTO instance VALUES ('1.2.3', ?, '1', '2', '{}', 0)", ("f" * 64,))
     answer = fluoromap("check")
     assert "run 1.2.3: its file is damaged; upload it again" in answer.stdout
     assert "1 runs are damaged" in one_sentence(answer)
