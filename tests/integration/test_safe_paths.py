@@ -13,9 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from processes import environment_of, process, wait_until_ready
+from processes import client_of, environment_of, process, wait_until_ready
 
-from fluoromap_service.cli.client import Client
 from fluoromap_service.cli.submission import find_files
 from fluoromap_service.cli.supervisor import free_port, program
 
@@ -88,7 +87,7 @@ def test_service_runs_nothing_of_the_folder(
         wait_until_ready(url, tmp_path / "data")
         inputs = find_files(simulated_study)
         assert inputs.activation_times is not None
-        with Client(url) as client:
+        with client_of(environment, port) as client:
             study = client.make_study("traps")
             assert not any(client.upload(study, path).objections for path in inputs.runs[:4])
             client.put_activation_times(study, inputs.activation_times)
@@ -100,7 +99,7 @@ def test_commands_run_nothing_of_the_folder(folder: Path, tmp_path: Path) -> Non
     environment = _without_safe_path(tmp_path / "data")
     _call(folder, environment, "db", "upgrade")
     _call(folder, environment, "plugins")
-    _call(folder, environment, "token", "create", "--name", "first", "--scope", "read")
+    _call(folder, environment, "token", "create", "--name", "first", "--scope", "write")
     _call(folder, environment, "check")
     _call(folder, environment, "audit", "verify")
     _call(folder, environment, "backup", str(tmp_path / "backup.tar"))
