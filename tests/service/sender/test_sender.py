@@ -26,6 +26,7 @@ from pydicom.dataset import Dataset
 from pynetdicom import evt
 from raw_headers import UNUSUAL, with_raw_values
 from sqlalchemy import select, update
+from structlog.testing import capture_logs
 
 from fluoromap_service.api.results.result_objects import delivery_objects
 from fluoromap_service.cli.supervisor import free_port
@@ -251,9 +252,7 @@ def test_question_whose_answers_never_end(study: FinishedStudy) -> None:
         ("http://localhost/dicom-web", False, True),
     ],
 )
-def test_authorization_crosses_no_network_without_tls(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], url: str, allowed: bool, sends: bool
-) -> None:
+def test_authorization_crosses_no_network_without_tls(tmp_path: Path, url: str, allowed: bool, sends: bool) -> None:
     secret = tmp_path / "authorization"
     secret.write_text(f"Bearer {SECRET}\n")
     target = StowTarget(name="archive", kind="dicomweb", url=url, authorization_file=secret, allow_insecure=allowed)
@@ -264,8 +263,9 @@ def test_authorization_crosses_no_network_without_tls(
         with pytest.raises(NotDelivered, match="allow_insecure") as failure, open_server(target):
             pass
         assert failure.value.failure.code == "insecure_target"
-    Sender([target])
-    warned = "authorization_without_tls" in capsys.readouterr().out
+    with capture_logs() as entries:
+        Sender([target])
+    warned = any(entry["event"] == "authorization_without_tls" for entry in entries)
     assert warned is (allowed or not sends)
     # Without a secret, a plain target is allowed: DICOM itself often has no TLS.
     with open_server(target.model_copy(update={"authorization_file": None, "allow_insecure": False})):
