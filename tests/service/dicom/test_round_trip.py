@@ -230,12 +230,12 @@ def test_jpeg_ls(make_xa: MakeXa) -> None:
 
 
 @pytest.mark.parametrize("syntax", [JPEGLSLossless, JPEGLSNearLossless])
-@pytest.mark.parametrize("bits_allocated", [8, 16])
-@pytest.mark.parametrize("bits_stored", range(2, 17))
+@pytest.mark.parametrize(
+    ("bits_stored", "bits_allocated"),
+    [(stored, 8) for stored in range(2, 9)] + [(stored, 16) for stored in range(2, 17)],
+)
 def test_jpeg_ls_of_every_precision(bits_stored: int, bits_allocated: int, syntax: str) -> None:
     """Some encoders state the bits of the pixels, others those of the cells."""
-    if bits_stored > bits_allocated:
-        pytest.skip("the pixels do not fit into their cells")
     cell = np.uint8 if bits_stored <= 8 else np.uint16
     image = np.random.default_rng(bits_stored).integers(0, 1 << bits_stored, (20, 24)).astype(cell)
     for precision in (bits_stored, 8 * image.itemsize):
