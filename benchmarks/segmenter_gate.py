@@ -247,7 +247,7 @@ def main() -> int:
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     sample = os.environ.get("FLUOROMAP_SAMPLE_DATA")
-    parser.add_argument("--quick", action="store_true", help="few runs of each kind: about 4 minutes on two cores")
+    parser.add_argument("--quick", action="store_true", help="few runs of each kind")
     parser.add_argument("--real", type=Path, default=Path(sample) if sample else None, metavar="DIR")
     parser.add_argument("--only", metavar="WORDS", help="the strata whose name has these words")
     parser.add_argument("--write", action="store_true", help="accept the present figures")
